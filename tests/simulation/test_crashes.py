@@ -208,6 +208,15 @@ def test_an_operators_order_does_not_wait_for_the_next_try() -> None:
     assert fate.resumed == [("robot1", newest)] * 4 and fate.world.acting(PART) == ["robot1"]
 
 
+def test_an_operator_whose_order_fails_is_told_at_once_and_why() -> None:
+    fate = alone(Rules())
+    fate.world.robots["robot1"].failing = 99
+    fate.crash()
+    fate.world.command("robot1", Handover(fate.world.request(), PART))
+    fate.after(200)
+    assert any(f"robot1 answers: robot1 cannot run {PART}: there is no memory" in line for line in fate.world.log)
+
+
 def test_a_robot_that_holds_less_than_was_acknowledged_does_not_resume_what_the_primary_could_not() -> None:
     """robot1 wrote more while it was alone; robot2 comes back as the restore fails."""
     fate = alone(Rules())

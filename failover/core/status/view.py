@@ -223,6 +223,12 @@ def _unread(turn: Turn) -> str:
     return "; ".join(told)
 
 
+def _unable(component: Component, turn: Turn) -> str:
+    left_s = max(component.retry_ns - turn.now_ns, 0) / NS_PER_S
+    again = f"; {turn.me} tries again in {left_s:.0f} s" if component.retry_ns < NEVER_NS else ""
+    return f"{turn.me} cannot run it: {component.unable}{again}"
+
+
 def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
     notes = []
     if waiting := restarts.note(component, turn.now_ns):
@@ -285,9 +291,7 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
     if component.cold:
         notes.append(f"its program does not wait at {turn.me}, so a takeover would take longer, or fail: {component.cold}")
     if component.unable:
-        left_s = max(component.retry_ns - turn.now_ns, 0) / NS_PER_S
-        again = f"; {turn.me} tries again in {left_s:.0f} s" if component.retry_ns < NEVER_NS else ""
-        notes.append(f"{turn.me} cannot run it: {component.unable}{again}")
+        notes.append(_unable(component, turn))
     if component.state is State.FROZEN:
         who = "no majority" if component.elects else "no robot entrusted with it"
         notes.append(f"held still: {who} hears this robot; it resumes when the peers are back")

@@ -59,7 +59,7 @@ def _refused(component: Component, turn: Turn, event: Exited) -> None:
     if component.acked is None or component.acked.generation != component.generation:
         _end_handover(component, turn, f"{component.name} ended meanwhile")
         component.flight, component.crashed = None, 0
-        cannot(component, turn, event.refusal, unusable=True, once_more=component.tries + 1 < TRIES_MAX)
+        cannot(component, turn, event.refusal, unusable=True, again=component.tries + 1 < TRIES_MAX)
     else:
         turn.say(component, event.refusal)
         crashed(component, turn, event.status)
@@ -89,22 +89,24 @@ def failed(component: Component, turn: Turn, event: ActFailed) -> None:
     elif component.state is State.RECOVERING:
         _not_resumed(component, turn, event)
     elif component.state is State.TAKING_OVER:
-        cannot(component, turn, event.message, unusable=event.damaged is not None)
+        is_read = event.damaged is None
+        cannot(component, turn, event.message, unusable=not is_read, again=is_read)
 
 
-def cannot(component: Component, turn: Turn, why: str, *, unusable: bool = False, once_more: bool | None = None) -> None:
+def cannot(component: Component, turn: Turn, why: str, *, unusable: bool, again: bool) -> None:
     """This robot cannot run it; the checkpoint stays, for another robot or another try.
 
     Args:
-        unusable: it cannot be read here, or its program refuses it: it counts as lost here. once_more: it is tried again all
-            the same; None: unless it is unusable.
+        unusable: the checkpoint cannot be read here, or its program refuses it: it counts as lost here.
+        again: this robot tries again after a pause.
     """
     component.unable, component.unusable, component.tries = why, unusable, component.tries + 1
     component.move(Cause.CANNOT)
     component.until_ns = turn.now_ns + turn.config.retry_ms * MS
     pause_ns = PAUSES[min(component.tries, len(PAUSES)) - 1] * turn.config.retry_ms * MS
-    component.retry_ns = turn.now_ns + pause_ns if (not unusable if once_more is None else once_more) else NEVER_NS
+    component.retry_ns = turn.now_ns + pause_ns if again else NEVER_NS
     turn.order(acts.Stop(component.name, component.epoch))
+    refuse_request(component, turn, f"{turn.me} cannot run {component.name}: {why}")
     turn.say(component, f"{turn.me} {Cause.CANNOT}: {why}")
 
 
@@ -164,7 +166,10 @@ def _resume(component: Component, turn: Turn) -> None:
     back = 1 if count <= rules.crash_limit else 2
     if count > rules.crash_limit + 1 or len(component.held) < back:
         crashes = f"{count} crashes in {rules.crash_window_ms // 1000} s"
-        _fail(component, turn, "no checkpoint to resume it from" if len(component.held) < back else crashes)
+        why = "no checkpoint to resume it from" if len(component.held) < back else crashes
+        how = restarts.how(component.status)
+        why = f"it died by {how}; {why}" if restarts.is_declared(component) else f"{why}; {UNDECLARED_CURE}"
+        _end(component, turn, Cause.FAIL, component.status, why)
         return
     position = component.held[-back]
     component.move(Cause.CRASH)
@@ -172,9 +177,9 @@ def _resume(component: Component, turn: Turn) -> None:
     restart_line(component, turn)
     component.until_ns = turn.now_ns + turn.config.restore_ms * MS
     component.lease_ns = component.told_ns = lease.first_ns(component, turn)
-    why = component.resumption
-    spec, lease_ns, generation = component.spec, component.lease_ns, component.generation
-    turn.order(acts.Restore(component.name, component.epoch, position, spec, lease_ns, why, generation))
+    resumption, spec = component.resumption, component.spec
+    lease_ns, generation = component.lease_ns, component.generation
+    turn.order(acts.Restore(component.name, component.epoch, position, spec, lease_ns, resumption, generation))
     again = f"saw it crash, {count} in the window, and resumes it" if not component.unresumed else "tries again to resume it"
     turn.say(component, f"{turn.me} {again} from {position.sequence}")
 
@@ -187,11 +192,11 @@ def _not_resumed(component: Component, turn: Turn, event: ActFailed) -> None:
     """
     turn.say(component, f"{turn.me} could not resume it: {event.message}")
     component.unresumed += 1
-    is_damaged = event.damaged is not None
-    if is_damaged and not _is_held_elsewhere(component, turn):
+    is_read = event.damaged is None
+    if not is_read and not _is_held_elsewhere(component, turn):
         component.held = [position for position in component.held if position != event.damaged]
-    elif is_damaged or component.unresumed > 1:
-        cannot(component, turn, event.message, unusable=is_damaged)
+    elif not is_read or component.unresumed > 1:
+        cannot(component, turn, event.message, unusable=not is_read, again=is_read)
         return
     _resume(component, turn)
 
@@ -201,13 +206,6 @@ def _is_held_elsewhere(component: Component, turn: Turn) -> bool:
     needed = component.acked or component.newest
     others = (entry.position for robot, entry in living_entries(component, turn) if turn.config.runs(robot))
     return not component.waits and needed is not None and any(position is not None and needed <= position for position in others)
-
-
-def _fail(component: Component, turn: Turn, why: str) -> None:
-    """It is not resumed again."""
-    status = component.status
-    why = f"it died by {restarts.how(status)}; {why}" if restarts.is_declared(component) else f"{why}; {UNDECLARED_CURE}"
-    _end(component, turn, Cause.FAIL, status, why)
 
 
 def _end_handover(component: Component, turn: Turn, why: str) -> None:
