@@ -189,7 +189,11 @@ def _fail_back(component: Component, turn: Turn, command: Failback) -> None:
 
 
 def _elsewhere(component: Component, turn: Turn, request: int, verb: str) -> None:
-    where = component.primary if component.primary not in ("", turn.me) else ""
-    over = "; failover run starts it anew" if component.state in ENDED else ""
-    cure = over or (f"; ask at {where}, which runs it" if where else "")
-    turn.order(acts.Answer(request, False, f"cannot {verb} {component.name}: here it is {component.state}{cure}"))
+    name, cure = component.name, ""
+    if component.state in ENDED:
+        cure = "; failover run starts it anew"
+    elif component.primary not in ("", turn.me):
+        cure = f"; ask at {component.primary}, which runs it"
+    elif component.unable:
+        cure = f", and {turn.me} could not resume it; failover handover {name} tries again, failover release {name} forgets it"
+    turn.order(acts.Answer(request, False, f"cannot {verb} {name}: here it is {component.state}{cure}"))

@@ -8,7 +8,7 @@ import pytest
 
 from checkpoint.model import Position
 from failover.core import acts
-from failover.core.events import Handover
+from failover.core.events import Handover, Stop
 from failover.core.types import MS, ComponentSpec, Launch, OnCrash, Rule, Rules, State
 from tests.simulation.invariants import seen_at, state_at
 from tests.simulation.teams import coordinated, elective, pair
@@ -215,6 +215,9 @@ def test_an_operator_whose_order_fails_is_told_at_once_and_why() -> None:
     fate.world.command("robot1", Handover(fate.world.request(), PART))
     fate.after(200)
     assert any(f"robot1 answers: robot1 cannot run {PART}: there is no memory" in line for line in fate.world.log)
+    fate.world.command("robot1", Stop(fate.world.request(), PART))
+    fate.after(50)
+    assert f"could not resume it; failover handover {PART} tries again, failover release {PART} forgets it" in fate.world.log[-1]
 
 
 def test_a_robot_that_holds_less_than_was_acknowledged_does_not_resume_what_the_primary_could_not() -> None:
