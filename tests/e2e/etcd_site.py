@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -222,4 +223,9 @@ def epoch(robot: RobotMachine) -> int:
 
 def speakers(robot: RobotMachine) -> list[int]:
     """The processes of the robot that speak with etcd."""
-    return [pid for pid in robot.processes() if b"agent.coordinator.process" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    found = []
+    for pid in robot.processes():
+        with contextlib.suppress(OSError):  # it has just ended
+            if b"agent.coordinator.process" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                found.append(pid)
+    return found
