@@ -184,6 +184,8 @@ class Component(Struct):
         sealed: on a primary, the position of the newest copy in the archive; sealed_ns: when that was taken, -1 if there is none.
         contender: a robot of another site where it was recovered, too, and in which span (`failover.core.election.sites`).
         promise: the sentence that the journal has of it, where it differs from the team's.
+        unable: why this robot could not resume it; others may, from the checkpoint here, unless that is ``unusable``: it cannot
+            be read, or its program refuses it. tries: how often in a row; retry_ns: this robot claims it no sooner.
         undelivered: why the last snapshot did not become a checkpoint; ``unstored``: on a standby, why it was not stored.
         keeps_state: on a standby: to go on from the newest snapshot is to start the program again.
         waiting: on a standby: the program that was ordered to wait, under ``waiting_epoch``; it is ready (``warm``) or, after
