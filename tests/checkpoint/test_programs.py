@@ -31,7 +31,7 @@ from tests.checkpoint.round_trip import (
 )
 
 ROUNDS = 3
-ATTEMPTS = 4
+ATTEMPTS = 20
 PATIENCE_S = 60.0
 ENVIRONMENT = {
     **{name: os.environ[name] for name in ("PATH", "PYTHONPATH") if name in os.environ},  # where numpy lies, on some machines
@@ -97,14 +97,14 @@ def test_an_ordinary_user_brings_programs_back_under_a_new_pid(case: Case) -> No
 def three_lives(case: Case, prepared: Callable[[Case, str], Path], *, keep_pid: bool = True) -> str:
     """Run a program twice, once undisturbed and once with three deaths: what it leaves must be the same.
 
-    One that has done its work before somebody came to look, on a busy machine, is begun again.
+    A program that ended before the test could capture it, on a busy machine, is begun again, and captured earlier.
     """
     undisturbed = prepared(case, "undisturbed")
     expected, status = run_to_the_end(case, undisturbed)
     for attempt in itertools.count(1):
         disturbed = prepared(case, f"disturbed-{attempt}")
         try:
-            ended_with = disturbed_life(case, disturbed, expected, keep_pid=keep_pid)
+            ended_with = disturbed_life(case, disturbed, expected, ROUNDS + 4 * attempt, keep_pid=keep_pid)
         except (ProcessGoneError, ProbeError):
             if attempt == ATTEMPTS or left_by(case, disturbed) != left_by(case, undisturbed):
                 raise
@@ -121,8 +121,12 @@ def left_by(case: Case, directory: Path) -> dict[str, bytes]:
     return {name: path.read_bytes() for name in ("out", *case.results) if (path := directory / name).exists()}
 
 
-def disturbed_life(case: Case, disturbed: Path, expected: dict[str, int], *, keep_pid: bool) -> int:
+def disturbed_life(case: Case, disturbed: Path, expected: dict[str, int], parts: int, *, keep_pid: bool) -> int:
     """Run a program with three deaths; its exit code.
+
+    Args:
+        expected: the sizes of the files that it leaves.
+        parts: it dies after each of the first parts of its work, of so many.
 
     Raises:
         ProcessGoneError, ProbeError: it had ended before it could be captured.
@@ -131,9 +135,8 @@ def disturbed_life(case: Case, disturbed: Path, expected: dict[str, int], *, kee
     size = 0
     for round_number in range(1, ROUNDS + 1):
         with ended(program):
-            size = wait_until_grown(
-                program, disturbed / case.progress, expected[case.progress] * round_number // (ROUNDS + 4), size
-            )
+            least = expected[case.progress] * round_number // parts
+            size = wait_until_grown(program, disturbed / case.progress, least, size)
             snapshot = captured_between_locks(program, hold=case.in_place)
         program = restored(snapshot, disturbed, keep_pid=keep_pid)
         assert (program.pid == snapshot.process.pid) == keep_pid
