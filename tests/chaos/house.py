@@ -29,6 +29,7 @@ from failover.config.team import Robot, Role, Team
 from failover.errors import AgentRefusedError, LostAgentError, NoAgentError
 from tests.chaos import actuator
 from tests.chaos.network import Network, address_of
+from tests.e2e import robots
 
 MEMBERS: Final[tuple[tuple[str, Role, tuple[int, ...]], ...]] = (
     ("robot1", "robot", (0, 1)),
@@ -61,14 +62,6 @@ STEP_MS: Final = 50
 """Between two commands of a program."""
 
 PROGRAMS: Final = Path(__file__).parent / "programs"
-MODULES: Final = {
-    "main_loop": b"agent.main",
-    "worker": b"agent.worker.process",
-    "keeper": b"checkpoint",
-    "guard": b"agent.guard.server",
-}
-"""Of each part of an agent: the third word of its command line, or the fourth."""
-
 AWAY: Final = (NoAgentError, LostAgentError)
 """Errors for a member whose agent is not there, or stands still."""
 
@@ -149,12 +142,7 @@ class Member:
 
     def parts(self, name: str) -> list[int]:
         """PIDs of its processes that play this part of an agent."""
-        found = []
-        for pid in self.machine.processes() if self.machine is not None else ():
-            with contextlib.suppress(OSError):
-                if MODULES[name] in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[2:5]:
-                    found.append(pid)
-        return found
+        return robots.parts(self.machine, name) if self.machine is not None else []
 
     def stop(self, pids: list[int]) -> None:
         """Have processes stand still."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import subprocess
 import sys
@@ -223,9 +222,4 @@ def epoch(robot: RobotMachine) -> int:
 
 def speakers(robot: RobotMachine) -> list[int]:
     """The processes of the robot that speak with etcd."""
-    found = []
-    for pid in robot.processes():
-        with contextlib.suppress(OSError):  # it has just ended
-            if b"agent.coordinator.process" in Path(f"/proc/{pid}/cmdline").read_bytes():
-                found.append(pid)
-    return found
+    return [pid for pid, words in robots.command_lines(robot) if "agent.coordinator.process" in words]

@@ -32,9 +32,6 @@ SPREAD_S = 0.15
 RESTORE_S = 0.25
 """A handover, its restore included, takes about so long."""
 
-NAMES = {"main_loop": b"agent.main", "worker": b"agent.worker.process", "keeper": b"checkpoint", "guard": b"agent.guard.server"}
-"""Module of each part of an agent: the third word of its command line."""
-
 WAYS = {
     "keeper": ("keeper",),
     "worker": ("worker",),
@@ -55,21 +52,11 @@ def pair(tmp_path: Path) -> Iterator[Pair]:
         yield both
 
 
-def parts(robot: RobotMachine, name: str) -> list[int]:
-    """PIDs of the robot's processes that play this part."""
-    found = []
-    for pid in robot.processes():
-        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-            if NAMES[name] in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[2:5]:
-                found.append(pid)
-    return found
-
-
 def kill(robot: RobotMachine, names: tuple[str, ...]) -> None:
     """Freeze these parts, then kill them at once: nobody sees another one die."""
     for name in names:
-        robots.until(lambda name=name: parts(robot, name), f"a {name} to kill")  # type: ignore[misc]
-    victims = [pid for name in names for pid in parts(robot, name)]
+        robots.until(lambda name=name: robots.parts(robot, name), f"a {name} to kill")  # type: ignore[misc]
+    victims = [pid for name in names for pid in robots.parts(robot, name)]
     for number in (signal.SIGSTOP, signal.SIGKILL):
         for pid in victims:
             with contextlib.suppress(ProcessLookupError):
@@ -79,7 +66,7 @@ def kill(robot: RobotMachine, names: tuple[str, ...]) -> None:
 def revived(robot: RobotMachine, names: tuple[str, ...]) -> None:
     """Bring the agent back, if it was killed, and wait until it answers."""
     if "main_loop" in names:
-        robots.until(lambda: not parts(robot, "main_loop") and not parts(robot, "worker"), "the agent to be gone")
+        robots.until(lambda: not robots.parts(robot, "main_loop") and not robots.parts(robot, "worker"), "the agent to be gone")
         robots.start_agent(robot)
     robots.until(lambda: robots.answers(robot), "the agent to answer")
 
@@ -122,7 +109,7 @@ def test_guards_that_die_together_cost_a_program_one_crash_and_nothing_that_was_
     first, second = pair
     robots.run(first, "count", "/usr/bin/python3", "-S", "-c", COUNT)
     robots.until(lambda: robots.checkpoints(second, "count") >= 3, "checkpoints at robot2")
-    robots.until(lambda: len(parts(first, "guard")) > 1, "a guard that waits")
+    robots.until(lambda: len(robots.parts(first, "guard")) > 1, "a guard that waits")
     kill(first, ("guard",))
     robots.until(lambda: robots.component(first, "count").get("restores") == 1, "the program to be resumed")
     decisions = [line for line in first.log.read_text().splitlines() if "saw it crash" in line or "could not resume" in line]
@@ -149,9 +136,9 @@ def settled(pair: Pair) -> RobotMachine | None:
 def copies(robot: RobotMachine) -> tuple[int, int]:
     """How many processes of the program there are, and how many of ours around it: vessels, and first processes of namespaces."""
     programs = ours = 0
-    for pid in robot.processes():
+    for pid, words in robots.command_lines(robot):
+        programs += words[:3] == ["/usr/bin/python3", "-S", "-c"]
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-            programs += Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"/usr/bin/python3\0-S\0-c\0")
             ours += Path(f"/proc/{pid}/exe").readlink().name.startswith("memfd:")
     return programs, ours
 

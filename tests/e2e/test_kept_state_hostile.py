@@ -7,7 +7,6 @@ FAILOVER_HOSTILE=all tries everything; otherwise one of each kind.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
 import signal
@@ -32,7 +31,6 @@ from failover.core.transitions.exits import TRIES_MAX
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_cooperative import protected
-from tests.e2e.test_deaths import parts
 
 NAME: Final = "/demo/robot1/count"
 SHOWN: Final = None if os.environ.get("FAILOVER_HOSTILE") == "all" else 1
@@ -66,7 +64,7 @@ class Left:
 
 def stop(robot: RobotMachine) -> None:
     robots.stop_agent(robot)
-    robots.until(lambda: not parts(robot, "main_loop") and not parts(robot, "worker"), "the agent to be gone")
+    robots.until(lambda: not robots.parts(robot, "main_loop") and not robots.parts(robot, "worker"), "the agent to be gone")
 
 
 @pytest.fixture(scope="module")
@@ -171,12 +169,7 @@ def cut_off(root: Path) -> None:
 
 def programs(robot: RobotMachine) -> list[int]:
     """Processes of the program."""
-    found = []
-    for pid in robot.processes():
-        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended
-            if b"counter.py" in Path(f"/proc/{pid}/cmdline").read_bytes():
-                found.append(pid)
-    return found
+    return [pid for pid, words in robots.command_lines(robot) if any("counter.py" in word for word in words)]
 
 
 @pytest.mark.parametrize("harm", [damage, cut_off][:SHOWN])

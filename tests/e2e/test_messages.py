@@ -172,11 +172,7 @@ class Field:
 
 def _processes(robot: RobotMachine, what: str) -> Iterator[int]:
     """The processes there that are the driver, or a sender."""
-    for pid in robot.processes():
-        try:
-            words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
-        except (FileNotFoundError, ProcessLookupError):
-            continue
+    for pid, words in robots.command_lines(robot):
         if str(PROGRAM) in words and what in " ".join(words) and "env" not in words and not robots.has_ended(pid):
             yield pid
 

@@ -21,8 +21,8 @@ def test_a_main_loop_and_its_worker_do_without_openssl_and_the_tables_of_names(t
 
 def mapped_by(robot: RobotMachine, part: str) -> str:
     """The mappings of a part of its agent, by what stands in the command line."""
-    for pid in robot.processes():
-        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended
-            if part in Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")[1:5]:
+    for pid, words in robots.command_lines(robot):
+        if part in words[1:5]:
+            with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended
                 return Path(f"/proc/{pid}/maps").read_text()
     raise AssertionError(f"{robot.name} has no {part}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import sys
@@ -42,12 +41,7 @@ def starts(folder: Path) -> int:
 
 def programs(robot: RobotMachine) -> list[int]:
     """Its processes there, as this machine numbers them."""
-    found = []
-    for pid in robot.processes():
-        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-            if b"counter.py" in Path(f"/proc/{pid}/cmdline").read_bytes():
-                found.append(pid)
-    return found
+    return [pid for pid, words in robots.command_lines(robot) if any("counter.py" in word for word in words)]
 
 
 def went_on(robot: RobotMachine, before: int) -> None:

@@ -33,13 +33,8 @@ pytestmark = [pytest.mark.root, pytest.mark.command("unshare")]
 
 def agents(member: RobotMachine) -> list[int]:
     """The processes of an agent: Python ones, without its host."""
-    found = []
-    for pid in member.processes():
-        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended
-            line = Path(f"/proc/{pid}/cmdline").read_bytes()
-            if b"\0agent." in line or b"\0checkpoint\0" in line:
-                found.append(pid)
-    return found
+    lines = robots.command_lines(member)
+    return [pid for pid, words in lines if any(word.startswith("agent.") or word == "checkpoint" for word in words[1:])]
 
 
 def pss_kb(member: RobotMachine) -> int:
