@@ -98,18 +98,22 @@ def _heir(component: Component, turn: Turn) -> str:
     chosen = next((robot for robot, entry in living_entries(component, turn) if entry.flags & WANTS), "")
     if chosen:
         return chosen
-    if turn.config.runs(turn.me) and (component.waits or component.tries < GIVEN_AWAY_TRIES or not component.unable):
+    is_able = not component.unable or component.tries < GIVEN_AWAY_TRIES
+    if turn.config.runs(turn.me) and (component.waits or is_able):
         return component.primary if component.waits else ""
-    if turn.config.by_majority or not turn.config.runs(turn.me):
-        sure = component.open or majority.holds_all(component, turn, turn.me, component.newest)
-        if not (sure and component.free):
-            return ""
-    if not vacant(component, turn):
+    if not vacant(component, turn) or not _is_sure(component, turn):
         return ""
     able = [peer for peer in turn.team.living(turn.now_ns) if turn.config.runs(peer.robot)]
     able = [peer for peer in able if _is_able(component, peer) and (peer.robot == component.primary or not component.waits)]
     order = sorted(able, key=lambda peer: (peer.robot != component.primary, placing(component, turn, peer.robot)))
     return order[0].robot if order else ""
+
+
+def _is_sure(component: Component, turn: Turn) -> bool:
+    """Whether no silent robot may hold a newer checkpoint; of the pair's rule a robot need not know."""
+    if turn.config.runs(turn.me) and not turn.config.by_majority:
+        return True
+    return component.free and (component.open or majority.holds_all(component, turn, turn.me, component.newest))
 
 
 def _is_able(component: Component, peer: Peer) -> bool:
