@@ -180,7 +180,8 @@ class Component(Struct):
             robot that made it, which may be before this robot's computer started; None: none came.
             lags: the archive has a newer one than this robot. looked_ns: all that the archive had at this instant is in this
             robot's store. freed_ns: since when this robot could take it over, 0: it could not; asked_ns: when it last ordered a
-            look into the archive for that. fresh: it has looked since then, and holds a checkpoint.
+            look into the archive for that. fresh: it has looked since then, and holds a checkpoint. let_go: this robot hears the
+            old primary, which does not run it.
         sealed: on a primary, the position of the newest copy in the archive; sealed_ns: when that was taken, -1 if there is none.
         contender: a robot of another site where it was recovered, too, and in which span (`failover.core.election.sites`).
         promise: the sentence that the journal has of it, where it differs from the team's.
@@ -301,6 +302,7 @@ class Component(Struct):
     freed_ns: int = 0
     asked_ns: int = 0
     fresh: bool = False
+    let_go: bool = False
     sealed: Position | None = None
     sealed_ns: int = -1
     contender: tuple[str, int] = ("", 0)

@@ -8,8 +8,9 @@ counts. Invariants:
 * A checkpoint from there never takes the place of a later one.
 * A checkpoint that the store found damaged is held no more: this robot looks into the archive again before it takes over.
 * Once etcd would vote for another robot, or the old primary lives and lets go (it may have lost its disk), this robot looks into
-  the archive again before it claims the component. What was put there before is in its store then, and it claims without the
-  wait for the old primary (``fresh``). Where the archive does not answer, that wait (``patience_ms``) is the limit.
+  the archive again before it claims the component; once more, if it hears that primary no longer. What was put there before is
+  in its store then, and it claims without the wait for the old primary (``fresh``). Where the archive does not answer, that wait
+  (``patience_ms``) is the limit. An operator's handover does not go before that look either; a promotion does.
 * A robot that had all that was acknowledged, and has lost it with its disk (``bare``), waits for the old primary all the same,
   which may come back with more than the archive has. So does a robot that hears it tell of more.
 * A component that ran elsewhere does not begin anew here before the archive has said that it has no copy.
@@ -156,11 +157,13 @@ def review(component: Component, turn: Turn) -> None:
     """Note since when a takeover is possible, and have the archive looked into since then."""
     if component.state is State.CLAIMING:
         return
-    is_let_go = _would_coordinator(component, turn) or (turn.alive(component.primary) and not turn.gone(component.primary))
-    if component.state not in _IDLE or not component.free or not is_let_go:
+    had_let_go, component.let_go = component.let_go, turn.alive(component.primary) and not turn.gone(component.primary)
+    is_possible = component.let_go or _would_coordinator(component, turn)
+    if component.state not in _IDLE or not component.free or not is_possible:
         component.freed_ns, component.fresh = 0, False
         return
-    component.freed_ns = component.freed_ns or turn.now_ns
+    is_lost = had_let_go and not component.let_go  # what it has put there meanwhile is to be found
+    component.freed_ns = turn.now_ns if is_lost else component.freed_ns or turn.now_ns
     has_looked = component.looked_ns >= component.freed_ns
     is_sole = not component.bare and majority.is_sole(component, turn, turn.me, component.newest)
     component.fresh = bool(turn.config.coordinator) and has_looked and bool(component.held) and is_sole
@@ -192,6 +195,15 @@ def waits(component: Component, turn: Turn) -> bool:
     if component.primary == turn.me and is_own(component, turn) and not component.lags:
         return False
     return turn.now_ns < component.freed_ns + _limit_ns(component, turn)
+
+
+def refuse(component: Component, turn: Turn) -> str:
+    """Why an operator's order to resume it here comes too soon; "" if it does not."""
+    if is_told_by_it_alone(component) or not waits(component, turn):
+        return ""
+    left_s = (component.freed_ns + _limit_ns(component, turn) - turn.now_ns) // (1_000 * MS) + 1
+    looks = f"{turn.me} asks the archive for a newer checkpoint of {component.name}"
+    return f"{looks}, for {left_s} s at most; ask again then, or promote {turn.me}"
 
 
 def _holds_all(component: Component, turn: Turn) -> bool:

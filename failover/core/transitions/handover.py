@@ -11,7 +11,7 @@ from failover.core.component import Cause, Component, Handing, Turn
 from failover.core.election import majority, sites
 from failover.core.election.pair import claim, exhaustion, renew, vacant
 from failover.core.election.votes import step_down
-from failover.core.replication import standby
+from failover.core.replication import archived, standby
 from failover.core.types import MS, State
 
 
@@ -44,6 +44,8 @@ def resume_here(component: Component, turn: Turn, request: int) -> None:
         where = " or ".join(one for one in (*component.entrusted, component.primary) if one)
         refusal = f"a newer checkpoint of {component.name} may be at {where}; start it, or promote {turn.me}"
         _answer(turn, request, False, refusal)
+    elif too_soon := archived.refuse(component, turn):
+        _answer(turn, request, False, too_soon)
     else:
         component.request = request
         claim(component, turn, component.newest, "an operator asked for it")

@@ -94,6 +94,15 @@ class Lonely:
         counter, rule = self.counter_of_robot1, RULES.index(Rule.ETCD)
         self.step(Received(Beat("robot1", 1, counter, 1, total=1, entries=(entry,), rule=rule), "wire"))
 
+    def live_beside_robot1(self, ms: int, entry: Entry) -> None:
+        """It says this of the component, and that it hears robot2."""
+        for _ in range(ms // 20):
+            self.live(20)
+            echo = Echo("robot2", 1, self.node.word().counter)
+            rule = RULES.index(Rule.ETCD)
+            beat = Beat("robot1", 2, self.counter, 1, total=1, echoes=(echo,), entries=(entry,), rule=rule)
+            self.step(Received(beat, "cable"))
+
     @property
     def held(self) -> list[Position]:
         return [position for one in self.node.status(self.now_ns).components for position in one.positions]
@@ -478,17 +487,48 @@ def test_where_the_old_primary_lives_and_has_lost_its_disk_the_archive_is_looked
     robot.live(1_000)
     robot.acts.clear()
 
-    def heard(ms: int) -> None:
-        for _ in range(ms // 20):
-            robot.live(20)
-            counter = robot.node.word().counter
-            nothing = Entry(NAME, STATES.index(State.STANDBY), 1, "robot1", flags=FREE | OPEN)
-            beat = Beat("robot1", 2, robot.counter, 1, total=1, echoes=(Echo("robot2", 1, counter),), entries=(nothing,))
-            robot.step(Received(msgspec.structs.replace(beat, rule=RULES.index(Rule.ETCD)), "cable"))
-
-    heard(1_000)
+    nothing = Entry(NAME, STATES.index(State.STANDBY), 1, "robot1", flags=FREE | OPEN)
+    robot.live_beside_robot1(1_000, nothing)
     assert robot.looks() and not robot.claims()
     robot.fetched(1, 9)
     robot.step(Looked(robot.now_ns, ()))
-    heard(1_000)
+    robot.live_beside_robot1(1_000, nothing)
     assert robot.claims() and robot.held[0] == position(1, 9)
+
+
+def test_once_the_old_primary_that_let_go_is_silent_the_archive_is_looked_into_once_more() -> None:
+    """It held more, so robot2 left the component to it; what it put into the archive came after that look."""
+    robot = Lonely()
+    robot.fetched(1, 5)
+    robot.live(1_000)
+    at = position(1, 9)
+    more = Entry(NAME, STATES.index(State.STANDBY), 1, "robot1", at.generation, at.sequence, at.digest, flags=FREE)
+    robot.live_beside_robot1(1_000, more)
+    robot.step(Looked(robot.now_ns, ()))
+    robot.live_beside_robot1(1_000, more)
+    assert not robot.claims()
+    robot.acts.clear()
+    robot.flags = FREE
+    robot.live(2_000)
+    assert robot.looks() and not robot.claims()
+    robot.fetched(1, 9)
+    robot.step(Looked(robot.now_ns, ()))
+    robot.live(100)
+    assert robot.claims() and robot.held[0] == at
+
+
+def test_an_operators_handover_does_not_go_before_the_look_into_the_archive() -> None:
+    robot = standby()
+    robot.flags = FREE
+    robot.live(500)
+    robot.acts.clear()
+    robot.step(Handover(7, NAME))
+    (answer,) = [act for act in robot.acts if isinstance(act, acts.Answer)]
+    assert not answer.ok and not robot.claims()
+    assert answer.sentence == (
+        f"robot2 asks the archive for a newer checkpoint of {NAME}, for 60 s at most; ask again then, or promote robot2"
+    )
+    robot.step(Looked(robot.now_ns))
+    robot.step(Handover(8, NAME))
+    robot.live(100)
+    assert robot.claims()
