@@ -74,8 +74,13 @@ class Exchange:
         return self._door is not None
 
     def neighbours(self) -> list[Path]:
-        """The name services of this robot, without this process."""
-        return [path for path in sorted(self.here.directory.glob(f"*.{ENDING}")) if path != self._path]
+        """The name services of this robot, without this process; none where this process has no descriptor left to look."""
+        try:
+            found = sorted(self.here.directory.glob(f"*.{ENDING}"))
+        except OSError:
+            self.lost += 1  # the next scan tells them
+            return []
+        return [path for path in found if path != self._path]
 
     def know(self, here: Here) -> None:
         """Go on with these members and keys: a door is made anew with them."""

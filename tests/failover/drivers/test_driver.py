@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import json
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -25,6 +26,7 @@ from failover.core.messaging.envelope import Encoding
 from failover.core.messaging.mailbox import MAILBOX_MAX
 from failover.core.naming.tree import Reach
 from failover.drivers import here as here_module
+from failover.drivers.exchange import Exchange
 from failover.drivers.here import Here, lives, stem
 from failover.drivers.local import LocalWay, Poller
 from failover.drivers.lookup import lookup, whole_tree
@@ -292,6 +294,19 @@ def test_a_driver_that_ends_withdraws_its_name(here: Here) -> None:
         until(lambda: not resolved(arm, "engine"))
         with pytest.raises(NameUnknownError, match="'engine' names nothing"):
             lookup(here, "engine")
+
+
+def test_a_name_service_without_a_descriptor_left_finds_its_neighbours_later(here: Here) -> None:
+    """Its thread goes on: else the driver has lost its name for good."""
+    with contextlib.closing(Exchange(here, "a.names")) as one, contextlib.closing(Exchange(here, "b.names")):
+        assert [path.name for path in one.neighbours()] == ["b.names"]
+        limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+        try:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
+            assert one.neighbours() == [] and one.lost == 1
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+        assert [path.name for path in one.neighbours()] == ["b.names"]
 
 
 def test_without_a_driver_the_sentence_says_so(here: Here) -> None:
