@@ -118,6 +118,13 @@ async def ship(two: Two, path: Path, size: int = SIZE) -> None:
         await asyncio.wait_for(two.shipper.ship("robot2", offer, file.fileno()), BOUND_S)
 
 
+async def until_sent(two: Two, shipping: asyncio.Task[None]) -> None:
+    """Wait until all chunks are on their way."""
+    while sum(isinstance(message, Chunk) for message in two.out.said) < 6:
+        assert not shipping.done(), shipping.exception()
+        await asyncio.sleep(0)
+
+
 def run(body: Coroutine[Any, Any, None]) -> None:
     asyncio.run(body)
 
@@ -316,14 +323,15 @@ def test_a_receiver_that_shows_nothing_is_not_waited_for(tmp_path: Path, content
     run(body())
 
 
-@pytest.mark.usefixtures("little_patience")
-def test_an_answer_that_went_with_its_connection_is_not_waited_for_as_for_a_slow_disk(tmp_path: Path, content: Path) -> None:
+def test_an_answer_that_went_with_its_connection_is_not_waited_for_as_for_a_slow_disk(
+    tmp_path: Path, content: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def body() -> None:
         free = asyncio.Event()
         two = Two(tmp_path, Slow(free))
         shipping = asyncio.create_task(ship(two, content))
-        while sum(isinstance(message, Chunk) for message in two.out.said) < 6:
-            await asyncio.sleep(0)
+        await until_sent(two, shipping)
+        monkeypatch.setattr(transfer, "PATIENCE_S", 0.2)
         two.back.connected = False
         free.set()
         while not two.desk.taken:
@@ -336,7 +344,6 @@ def test_an_answer_that_went_with_its_connection_is_not_waited_for_as_for_a_slow
     run(body())
 
 
-@pytest.mark.usefixtures("little_patience")
 def test_a_receiver_that_connects_anew_and_is_still_at_it_is_waited_for(
     tmp_path: Path, content: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -346,8 +353,8 @@ def test_a_receiver_that_connects_anew_and_is_still_at_it_is_waited_for(
         free = asyncio.Event()
         two = Two(tmp_path, Slow(free))
         shipping = asyncio.create_task(ship(two, content))
-        while sum(isinstance(message, Chunk) for message in two.out.said) < 6:
-            await asyncio.sleep(0)
+        await until_sent(two, shipping)
+        monkeypatch.setattr(transfer, "PATIENCE_S", 1.0)
         two.shipper.answers_may_be_lost("robot2")
         await asyncio.sleep(3 * transfer.PATIENCE_S)
         assert not shipping.done()
