@@ -17,7 +17,7 @@ from typing import Final
 
 from tests.chaos.house import LEASE_MS, House, Member, send
 from tests.chaos.network import Way
-from tests.e2e import robots
+from tests.robot_processes import command_lines
 
 LEASE_S: Final = LEASE_MS / 1_000
 PARTS: Final[tuple[tuple[str, ...], ...]] = (
@@ -325,7 +325,7 @@ def _ways(senders: list[Member], receivers: list[Member]) -> set[Way]:
 
 def _programs(member: Member, name: str) -> Iterator[int]:
     """PIDs of a component's program: the process whose command line names it, not those of ours around it."""
-    for pid, words in robots.command_lines(member.machine) if member.machine is not None else ():
+    for pid, words in command_lines(member.machine) if member.machine is not None else ():
         if not {"agent.guard.server", "checkpoint"} & set(words[:5]) and {name, f"name={name}"} & set(words):
             yield pid
 

@@ -29,7 +29,7 @@ from failover.config.team import Robot, Role, Team
 from failover.errors import AgentRefusedError, LostAgentError, NoAgentError
 from tests.chaos import actuator
 from tests.chaos.network import Network, address_of
-from tests.e2e import robots
+from tests.robot_processes import parts
 
 MEMBERS: Final[tuple[tuple[str, Role, tuple[int, ...]], ...]] = (
     ("robot1", "robot", (0, 1)),
@@ -142,7 +142,7 @@ class Member:
 
     def parts(self, name: str) -> list[int]:
         """PIDs of its processes that play this part of an agent."""
-        return robots.parts(self.machine, name) if self.machine is not None else []
+        return parts(self.machine, name) if self.machine is not None else []
 
     def stop(self, pids: list[int]) -> None:
         """Have processes stand still."""

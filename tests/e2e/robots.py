@@ -5,7 +5,6 @@ They are the demo's own robots (`failover.cli.demo.robots`), so that people watc
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import os
 import signal
@@ -34,9 +33,6 @@ LOG_LINES = 80
 
 NO_ANSWER = (NoAgentError, LostAgentError)
 """What a robot whose agent is being replaced says."""
-
-MODULES = {"main_loop": "agent.main", "worker": "agent.worker.process", "keeper": "checkpoint", "guard": "agent.guard.server"}
-"""Of each part of an agent: the third word of its command line, or the fourth."""
 
 T = TypeVar("T")
 
@@ -220,19 +216,6 @@ def stop_agent(robot: RobotMachine) -> None:
     agent = host_pid(robot, robot.status()["pid"])
     os.kill(agent, signal.SIGTERM)
     until(lambda: has_ended(agent), f"the agent of {robot.name} to end")
-
-
-def command_lines(robot: RobotMachine) -> Iterator[tuple[int, list[str]]]:
-    """Its processes and the words of their command lines, without those that end meanwhile."""
-    for pid in robot.processes():
-        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-            words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
-            yield pid, words
-
-
-def parts(robot: RobotMachine, name: str) -> list[int]:
-    """Its processes that play this part of an agent; see `MODULES`."""
-    return [pid for pid, words in command_lines(robot) if MODULES[name] in words[2:5]]
 
 
 def has_ended(pid: int) -> bool:

@@ -18,6 +18,7 @@ from failover.client.control import LENGTH, MESSAGE_LIMIT, REQUEST_LIMIT, Contro
 from failover.errors import AgentRefusedError, RequestError
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
+from tests.robot_processes import parts
 
 SEED = int(os.environ.get("FAILOVER_FUZZ_SEED", random.randrange(1 << 30)))
 TURNS = int(os.environ.get("FAILOVER_FUZZ_TURNS", "300"))
@@ -154,7 +155,7 @@ def test_a_client_that_hangs_up_midway_leaves_nothing(pair: Pair, sent: bytes) -
 
 
 def test_half_requests_on_many_connections_take_a_bounded_memory_and_no_place(pair: Pair) -> None:
-    (worker,) = robots.parts(pair[0], "worker")
+    (worker,) = parts(pair[0], "worker")
     half = LENGTH.pack(REQUEST_LIMIT) + bytes(REQUEST_LIMIT - 1)
     before = procfs.status(worker).resident_size
     with ExitStack() as held:

@@ -20,6 +20,7 @@ import pytest
 from failover.errors import AgentRefusedError
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
+from tests.robot_processes import command_lines, parts
 
 pytestmark = pytest.mark.root
 
@@ -55,8 +56,8 @@ def pair(tmp_path: Path) -> Iterator[Pair]:
 def kill(robot: RobotMachine, names: tuple[str, ...]) -> None:
     """Freeze these parts, then kill them at once: nobody sees another one die."""
     for name in names:
-        robots.until(lambda name=name: robots.parts(robot, name), f"a {name} to kill")  # type: ignore[misc]
-    victims = [pid for name in names for pid in robots.parts(robot, name)]
+        robots.until(lambda name=name: parts(robot, name), f"a {name} to kill")  # type: ignore[misc]
+    victims = [pid for name in names for pid in parts(robot, name)]
     for number in (signal.SIGSTOP, signal.SIGKILL):
         for pid in victims:
             with contextlib.suppress(ProcessLookupError):
@@ -66,7 +67,7 @@ def kill(robot: RobotMachine, names: tuple[str, ...]) -> None:
 def revived(robot: RobotMachine, names: tuple[str, ...]) -> None:
     """Bring the agent back, if it was killed, and wait until it answers."""
     if "main_loop" in names:
-        robots.until(lambda: not robots.parts(robot, "main_loop") and not robots.parts(robot, "worker"), "the agent to be gone")
+        robots.until(lambda: not parts(robot, "main_loop") and not parts(robot, "worker"), "the agent to be gone")
         robots.start_agent(robot)
     robots.until(lambda: robots.answers(robot), "the agent to answer")
 
@@ -109,7 +110,7 @@ def test_guards_that_die_together_cost_a_program_one_crash_and_nothing_that_was_
     first, second = pair
     robots.run(first, "count", "/usr/bin/python3", "-S", "-c", COUNT)
     robots.until(lambda: robots.checkpoints(second, "count") >= 3, "checkpoints at robot2")
-    robots.until(lambda: len(robots.parts(first, "guard")) > 1, "a guard that waits")
+    robots.until(lambda: len(parts(first, "guard")) > 1, "a guard that waits")
     kill(first, ("guard",))
     robots.until(lambda: robots.component(first, "count").get("restores") == 1, "the program to be resumed")
     decisions = [line for line in first.log.read_text().splitlines() if "saw it crash" in line or "could not resume" in line]
@@ -136,7 +137,7 @@ def settled(pair: Pair) -> RobotMachine | None:
 def copies(robot: RobotMachine) -> tuple[int, int]:
     """How many processes of the program there are, and how many of ours around it: vessels, and first processes of namespaces."""
     programs = ours = 0
-    for pid, words in robots.command_lines(robot):
+    for pid, words in command_lines(robot):
         programs += words[:3] == ["/usr/bin/python3", "-S", "-c"]
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):
             ours += Path(f"/proc/{pid}/exe").readlink().name.startswith("memfd:")

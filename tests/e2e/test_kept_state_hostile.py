@@ -31,6 +31,7 @@ from failover.core.transitions.exits import TRIES_MAX
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_cooperative import protected
+from tests.robot_processes import command_lines, parts
 
 NAME: Final = "/demo/robot1/count"
 SHOWN: Final = None if os.environ.get("FAILOVER_HOSTILE") == "all" else 1
@@ -64,7 +65,7 @@ class Left:
 
 def stop(robot: RobotMachine) -> None:
     robots.stop_agent(robot)
-    robots.until(lambda: not robots.parts(robot, "main_loop") and not robots.parts(robot, "worker"), "the agent to be gone")
+    robots.until(lambda: not parts(robot, "main_loop") and not parts(robot, "worker"), "the agent to be gone")
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +170,7 @@ def cut_off(root: Path) -> None:
 
 def programs(robot: RobotMachine) -> list[int]:
     """Processes of the program."""
-    return [pid for pid, words in robots.command_lines(robot) if any("counter.py" in word for word in words)]
+    return [pid for pid, words in command_lines(robot) if any("counter.py" in word for word in words)]
 
 
 @pytest.mark.parametrize("harm", [damage, cut_off][:SHOWN])

@@ -23,6 +23,7 @@ from failover.drivers.here import DIRECTORY, ROBOT, TEAM
 from tests.e2e import robots
 from tests.e2e.messengers import LIMIT, PATH, SENDER_SHIFT, Record
 from tests.e2e.test_links import TWO, links
+from tests.robot_processes import command_lines
 
 AHEAD = 0.05
 """The part of all messages that senders may be ahead of what the test waits for."""
@@ -172,7 +173,7 @@ class Field:
 
 def _processes(robot: RobotMachine, what: str) -> Iterator[int]:
     """The processes there that are the driver, or a sender."""
-    for pid, words in robots.command_lines(robot):
+    for pid, words in command_lines(robot):
         if str(PROGRAM) in words and what in " ".join(words) and "env" not in words and not robots.has_ended(pid):
             yield pid
 

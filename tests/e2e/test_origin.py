@@ -13,6 +13,7 @@ from tests.e2e.robots import RobotMachine
 from tests.e2e.test_cooperative import origins, protected
 from tests.e2e.test_hooks import move
 from tests.e2e.test_links import TWO
+from tests.robot_processes import parts
 
 pytestmark = pytest.mark.root
 
@@ -54,7 +55,7 @@ def test_a_takeover_that_goes_on_from_this_robots_own_checkpoint_is_called_one(t
     """The other robot ran it for a while, and none of its checkpoints came back."""
     with robots.two_robots(tmp_path, cables=TWO) as (first, second):
         protected(first, second, tmp_path)
-        main_loop = robots.parts(first, "main_loop")
+        main_loop = parts(first, "main_loop")
         for robot in (first, second):
             robots.cable(robot, "down")  # snapshots travel over this one alone
         for pid in main_loop:

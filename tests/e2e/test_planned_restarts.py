@@ -18,6 +18,7 @@ from failover.cli.demo.robots import LEASE_MS
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_deaths import COUNT, kill
+from tests.robot_processes import parts
 
 pytestmark = pytest.mark.root
 
@@ -114,7 +115,7 @@ def test_an_agent_that_does_not_come_back_or_dies_in_the_grace_is_replaced_after
     expect_it_acts(first)
     robots.start_agent(first)
     kill(first, ("main_loop", "worker"))  # before it could be heard, perhaps
-    robots.until(lambda: not robots.parts(first, "main_loop"), "the agent to be gone")
+    robots.until(lambda: not parts(first, "main_loop"), "the agent to be gone")
     robots.until_taken_over(second)
     ran, before = ran_ns(program), len(robots.numbers(second))
     robots.until(lambda: len(robots.numbers(second)) > before + 20, "it to go on")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
+from tests.robot_processes import command_lines
 
 
 def test_a_main_loop_and_its_worker_do_without_openssl_and_the_tables_of_names(tmp_path: Path) -> None:
@@ -21,7 +22,7 @@ def test_a_main_loop_and_its_worker_do_without_openssl_and_the_tables_of_names(t
 
 def mapped_by(robot: RobotMachine, part: str) -> str:
     """The mappings of a part of its agent, by what stands in the command line."""
-    for pid, words in robots.command_lines(robot):
+    for pid, words in command_lines(robot):
         if part in words[1:5]:
             with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended
                 return Path(f"/proc/{pid}/maps").read_text()

@@ -18,6 +18,7 @@ from checkpoint.snapshot import format
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_deaths import COUNT, numbers
+from tests.robot_processes import parts
 
 pytestmark = pytest.mark.root
 
@@ -93,16 +94,16 @@ def kept_aside(robot: RobotMachine) -> int:
 def parts_of_it(robot: RobotMachine, name: str) -> list[int]:
     """The processes of that kind which the program has to do with: spare guards and keepers wait besides."""
     if name == "worker":
-        return robots.parts(robot, name)
+        return parts(robot, name)
     program = robots.host_pid(robot, robots.component(robot, "count")["pid"])
     if name == "guard":
-        return [pid for pid in robots.parts(robot, name) if pid == procfs.status(program).ppid]
+        return [pid for pid in parts(robot, name) if pid == procfs.status(program).ppid]
     return robots.until(lambda: busy_keepers(robot), "one keeper alone to work")
 
 
 def busy_keepers(robot: RobotMachine) -> list[int]:
     """The keeper that uses processor time while snapshots are taken, once it is the only one."""
-    before = {pid: activity(pid)[1] for pid in robots.parts(robot, "keeper")}
+    before = {pid: activity(pid)[1] for pid in parts(robot, "keeper")}
     taken = robots.checkpoints(robot, "count")
     robots.until(lambda: robots.checkpoints(robot, "count") > taken + 5, "snapshots")
     busy = [pid for pid in before if activity(pid)[1] > before[pid]]
@@ -114,7 +115,7 @@ def busy_keepers(robot: RobotMachine) -> list[int]:
 def test_who_stops_and_wakes_up_stale_has_not_run_on(pair: Pair, way: str) -> None:
     first, second = pair
     program = protected_count(pair)
-    stopped = [pid for name in STOPPED[way] for pid in robots.parts(first, name)]
+    stopped = [pid for name in STOPPED[way] for pid in parts(first, name)]
     for pid in stopped:
         os.kill(pid, signal.SIGSTOP)
     try:

@@ -12,6 +12,7 @@ import pytest
 
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
+from tests.robot_processes import parts
 
 COUNT = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
 HOLDING_ANOTHER = "import os\nkept = os.pidfd_open(1)\n" + COUNT
@@ -114,7 +115,7 @@ def test_a_stranger_that_loses_its_guard_does_not_run_twice(pair: Pair, tmp_path
     assert robots.failover(first, "protect", str(pid), "--name", "count").returncode == 0
     robots.until(lambda: robots.component(first, "count").get("protection") == "protected", "a checkpoint at robot2")
     program = robots.host_pid(first, pid)
-    for guard in robots.parts(first, "guard"):
+    for guard in parts(first, "guard"):
         os.kill(guard, signal.SIGKILL)
     robots.until(lambda: not Path(f"/proc/{program}").exists(), "the stranger to be ended")
     robots.until(lambda: robots.component(first, "count").get("restores"), "it to be resumed")

@@ -15,6 +15,7 @@ from failover.config.team import Role
 from tests.e2e import robots, teams
 from tests.e2e.teams import hears_all
 from tests.e2e.test_orders import COUNTING, counted
+from tests.robot_processes import command_lines
 
 ROLES: dict[str, Role] = {"robot1": "robot", "robot2": "robot", "gate": "witness"}
 NOT_ITS_OWN = (
@@ -33,7 +34,7 @@ pytestmark = [pytest.mark.root, pytest.mark.command("unshare")]
 
 def agents(member: RobotMachine) -> list[int]:
     """The processes of an agent: Python ones, without its host."""
-    lines = robots.command_lines(member)
+    lines = command_lines(member)
     return [pid for pid, words in lines if any(word.startswith("agent.") or word == "checkpoint" for word in words[1:])]
 
 

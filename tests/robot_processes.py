@@ -1,0 +1,25 @@
+"""The processes of a test's robot, by what stands in their command lines."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from failover.cli.demo.robots import RobotMachine
+
+MODULES = {"main_loop": "agent.main", "worker": "agent.worker.process", "keeper": "checkpoint", "guard": "agent.guard.server"}
+"""Of each part of an agent: the third word of its command line, or the fourth."""
+
+
+def command_lines(robot: RobotMachine) -> Iterator[tuple[int, list[str]]]:
+    """Its processes and the words of their command lines, without those that end meanwhile."""
+    for pid in robot.processes():
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
+            yield pid, words
+
+
+def parts(robot: RobotMachine, name: str) -> list[int]:
+    """Its processes that play this part of an agent; see `MODULES`."""
+    return [pid for pid, words in command_lines(robot) if MODULES[name] in words[2:5]]
