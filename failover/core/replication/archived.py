@@ -199,7 +199,7 @@ def waits(component: Component, turn: Turn) -> bool:
 
 def refuse(component: Component, turn: Turn) -> str:
     """Why an operator's order to resume it here comes too soon; "" if it does not."""
-    if is_told_by_it_alone(component) or not waits(component, turn):
+    if not component.freed_ns or is_told_by_it_alone(component) or not waits(component, turn):
         return ""
     left_s = (component.freed_ns + _limit_ns(component, turn) - turn.now_ns) // (1_000 * MS) + 1
     looks = f"{turn.me} asks the archive for a newer checkpoint of {component.name}"
