@@ -194,14 +194,14 @@ def waits(component: Component, turn: Turn) -> bool:
         return component.primary != turn.me or component.has_begun
     if component.primary == turn.me and is_own(component, turn) and not component.lags:
         return False
-    return turn.now_ns < component.freed_ns + _limit_ns(component, turn)
+    return turn.now_ns < _until_ns(component, turn)
 
 
 def refuse(component: Component, turn: Turn) -> str:
     """Why an operator's order to resume it here comes too soon; "" if it does not."""
     if not component.freed_ns or is_told_by_it_alone(component) or not waits(component, turn):
         return ""
-    left_s = (component.freed_ns + _limit_ns(component, turn) - turn.now_ns) // (1_000 * MS) + 1
+    left_s = (_until_ns(component, turn) - turn.now_ns) // (1_000 * MS) + 1
     looks = f"{turn.me} asks the archive for a newer checkpoint of {component.name}"
     return f"{looks}, for {left_s} s at most; ask again then, or promote {turn.me}"
 
@@ -252,8 +252,10 @@ def is_own(component: Component, turn: Turn) -> bool:
     return component.newest is not None and component.newest.generation % (PEERS_MAX + 1) == turn.config.place
 
 
-def _limit_ns(component: Component, turn: Turn) -> int:
+def _until_ns(component: Component, turn: Turn) -> int:
+    """Until when this robot waits for the archive."""
     peer = turn.team.peers.get(component.primary)
     lately_ns = component.freed_ns - HEARD_LATELY * turn.config.loyalty_ns
     is_standby = turn.me in component.entrusted and peer is not None and peer.boot > 0 and peer.heard_ns >= lately_ns
-    return (turn.config.retry_ms if is_standby and not component.lags else turn.config.patience_ms) * MS
+    limit_ms = turn.config.retry_ms if is_standby and not component.lags else turn.config.patience_ms
+    return component.freed_ns + limit_ms * MS
