@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,9 +14,16 @@ MODULES = {"main_loop": "agent.main", "worker": "agent.worker.process", "keeper"
 def command_lines(robot: RobotMachine) -> Iterator[tuple[int, list[str]]]:
     """Its processes and the words of their command lines, without those that end meanwhile."""
     for pid in robot.processes():
-        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-            words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
-            yield pid, words
+        try:
+            line = Path(f"/proc/{pid}/cmdline").read_bytes()
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+        yield pid, line.decode(errors="replace").split("\0")
+
+
+def naming(robot: RobotMachine, what: str) -> list[int]:
+    """Its processes whose command lines have this in a word."""
+    return [pid for pid, words in command_lines(robot) if any(what in word for word in words)]
 
 
 def parts(robot: RobotMachine, name: str) -> list[int]:

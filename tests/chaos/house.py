@@ -62,6 +62,7 @@ STEP_MS: Final = 50
 """Between two commands of a program."""
 
 PROGRAMS: Final = Path(__file__).parent / "programs"
+
 AWAY: Final = (NoAgentError, LostAgentError)
 """Errors for a member whose agent is not there, or stands still."""
 

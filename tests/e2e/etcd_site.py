@@ -15,7 +15,7 @@ from failover.cli.demo.robots import Pace, RobotMachine, ip_command, ip_inside, 
 from failover.errors import AgentRefusedError
 from tests.agent.coordinator.etcd_server import EtcdServer, three_members
 from tests.e2e import robots
-from tests.robot_processes import command_lines
+from tests.robot_processes import naming
 
 ROUTER: Final = "10.71.9.254"
 HOSTS: Final = ("10.71.9.11", "10.71.9.12", "10.71.9.13")
@@ -223,4 +223,4 @@ def epoch(robot: RobotMachine) -> int:
 
 def speakers(robot: RobotMachine) -> list[int]:
     """The processes of the robot that speak with etcd."""
-    return [pid for pid, words in command_lines(robot) if "agent.coordinator.process" in words]
+    return naming(robot, "agent.coordinator.process")

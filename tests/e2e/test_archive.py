@@ -19,7 +19,7 @@ from tests import s3_servers
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_deaths import COUNT, kill, revived
-from tests.robot_processes import command_lines, parts
+from tests.robot_processes import naming, parts
 
 pytest.importorskip("cryptography")
 
@@ -188,7 +188,7 @@ def newest(place: Path) -> str:
 
 def is_gone(robot: RobotMachine) -> bool:
     """Whether nothing of its agent and of its programs is left."""
-    is_running = any("print(i, flush=True)" in " ".join(words) for _, words in command_lines(robot))
+    is_running = naming(robot, "print(i, flush=True)")
     return not is_running and not any(parts(robot, name) for name in ("main_loop", "worker", "guard", "keeper"))
 
 
@@ -226,4 +226,4 @@ def test_the_process_of_an_archive_may_die_and_ends_with_its_worker(tmp_path: Pa
 
 
 def archivists(robot: RobotMachine) -> list[int]:
-    return [pid for pid, words in command_lines(robot) if "agent.archive.process" in words]
+    return naming(robot, "agent.archive.process")

@@ -31,7 +31,7 @@ from failover.core.transitions.exits import TRIES_MAX
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_cooperative import protected
-from tests.robot_processes import command_lines, parts
+from tests.robot_processes import naming, parts
 
 NAME: Final = "/demo/robot1/count"
 SHOWN: Final = None if os.environ.get("FAILOVER_HOSTILE") == "all" else 1
@@ -170,7 +170,7 @@ def cut_off(root: Path) -> None:
 
 def programs(robot: RobotMachine) -> list[int]:
     """Processes of the program."""
-    return [pid for pid, words in command_lines(robot) if any("counter.py" in word for word in words)]
+    return naming(robot, "counter.py")
 
 
 @pytest.mark.parametrize("harm", [damage, cut_off][:SHOWN])

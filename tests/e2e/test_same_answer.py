@@ -89,10 +89,7 @@ def test_both_robots_answer_the_same_after_a_part_was_killed(pair: Pair, part: s
 def test_a_program_whose_agent_is_killed_is_healthy_at_no_robot(pair: Pair) -> None:
     first, second = pair
     kill(first, ("main_loop",))
-    robots.until(
-        lambda: not parts(first, "main_loop") and not parts(first, "worker"),
-        "the agent to be gone",
-    )
+    robots.until(lambda: not parts(first, "main_loop") and not parts(first, "worker"), "the agent to be gone")
     robots.until(lambda: answer(second)[0] == 1, "robot2 to say that not all is well")
     robots.until_taken_over(second)
     assert answer(second)[0] == 1, "it has no standby"

@@ -13,7 +13,7 @@ from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_cooperative import COUNTER, lines, numbers, origins, shown
 from tests.e2e.test_deaths import kill, revived
-from tests.robot_processes import command_lines
+from tests.robot_processes import naming
 
 SCRIPT = (
     "import os, sys\nwith open(sys.argv[1], 'a') as starts:\n    starts.write('started\\n')\nprint('# imported - -')\n" + COUNTER
@@ -42,7 +42,7 @@ def starts(folder: Path) -> int:
 
 def programs(robot: RobotMachine) -> list[int]:
     """Its processes there, as this machine numbers them."""
-    return [pid for pid, words in command_lines(robot) if any("counter.py" in word for word in words)]
+    return naming(robot, "counter.py")
 
 
 def went_on(robot: RobotMachine, before: int) -> None:
